@@ -30,7 +30,7 @@ from seasonscapes.rendering.sky_patches import (
     sky_patches,
     sky_second_moments,
 )
-from seasonscapes.rendering.sun_visibility import first_sample_visible, sum_facing, sum_incidence, visible_cosine
+from seasonscapes.rendering.sun_visibility import start_first_samples, start_sum_facing, sum_incidence, visible_cosine
 from seasonscapes.rendering.transport import trace_points, trace_view, view_albedo
 from seasonscapes.rendering.view_samples import pixel_moments, sample_moments, view_samples
 from seasonscapes.sky.illumination import Illumination, uniform_sky
@@ -85,7 +85,7 @@ def test_few_shadow_rays_say_what_all_do(valley, azimuth_deg, elevation_deg):
     assert np.sqrt(np.mean((quick - all_rays) ** 2)) < 0.03 * all_rays.mean()
     assert quick.mean() == pytest.approx(all_rays.mean(), rel=0.005)
     # Without rays samples are dark where they face away alone, so that there is no less light.
-    facing = sum_facing(ready.rays, sun, every)
+    facing = start_sum_facing(ready.rays, sun, every)()
     assert (facing >= all_rays).all()
     assert (facing <= unoccluded).all()
     assert facing.mean() > all_rays.mean()
@@ -93,12 +93,12 @@ def test_few_shadow_rays_say_what_all_do(valley, azimuth_deg, elevation_deg):
     by_sample = visible_cosine(ready.rays, sun)
     np.testing.assert_allclose(all_rays, (by_sample * weight).sum(axis=1), atol=1e-5)
     # First samples by themselves meet the same points of the disc as among the others.
-    np.testing.assert_array_equal(first_sample_visible(ready.rays, sun), (by_sample * weight)[:, 0] > 0.0)
+    np.testing.assert_array_equal(start_first_samples(ready.rays, sun)(), (by_sample * weight)[:, 0] > 0.0)
     # Ground that is raised below the same ridges is raised for all of its rays.
     raised = view_raised(ready, 20.0)
-    again = first_sample_visible(raised.rays, sun)
+    again = start_first_samples(raised.rays, sun)()
     np.testing.assert_array_equal(again, (visible_cosine(raised.rays, sun).reshape(weight.shape) * weight)[:, 0] > 0.0)
-    assert again.sum() > first_sample_visible(ready.rays, sun).sum()
+    assert again.sum() > start_first_samples(ready.rays, sun)().sum()
 
 
 def test_parts_of_shadow_rays_say_what_all_at_once_do(valley, monkeypatch):
@@ -107,14 +107,14 @@ def test_parts_of_shadow_rays_say_what_all_at_once_do(valley, monkeypatch):
     sun, every = sun_at(110.0, 35.0).sun, np.arange(ready.rays.receivers)
     samples = ready.rays.receivers * ready.rays.samples
     whole = {rays: visible_cosine(ready.rays, sun, rays_per_sample=rays) for rays in (1, 4)}
-    sums, first = sum_incidence(ready.rays, sun, every), first_sample_visible(ready.rays, sun)
+    sums, first = sum_incidence(ready.rays, sun, every), start_first_samples(ready.rays, sun)()
     assert np.abs(whole[1] - whole[4]).max() > 0.0
     for lanes in (samples, samples // 3 + 1):
         monkeypatch.setattr(sun_visibility, "LANES", lanes)
         for rays, values in whole.items():
             np.testing.assert_array_equal(visible_cosine(ready.rays, sun, rays_per_sample=rays), values)
         np.testing.assert_allclose(sum_incidence(ready.rays, sun, every), sums, atol=1e-5)
-        np.testing.assert_array_equal(first_sample_visible(ready.rays, sun), first)
+        np.testing.assert_array_equal(start_first_samples(ready.rays, sun)(), first)
 
 
 @pytest.mark.parametrize("divisor", [1, 3, 16, 255, 1024, 4099])

@@ -286,26 +286,12 @@ def terrain_image(view: RelightableView, values: np.ndarray) -> np.ndarray:
     return image
 
 
-def relit_surface_radiance(view: RelightableView, illumination: Illumination) -> np.ndarray:
-    """Compute the radiance that leaves the terrain in each of the n terrain pixels.
-
-    Parameters
-    ----------
-    view
-        From `relightable_view`.
-    illumination
-        Sky, sun and moon.
-
-    Returns
-    -------
-    numpy.ndarray
-        ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black.
-    """
-    return _start_surface_radiance(view, illumination)()
-
-
 def _start_surface_radiance(view: RelightableView, illumination: Illumination) -> Callable[[], np.ndarray]:
-    """Start the shadow rays of `relit_surface_radiance`, and return the function that gives its result."""
+    """Start the shadow rays, and return the function that gives the radiance that leaves the terrain in each of the n pixels.
+
+    ``(n, 3)`` float32 [cd/m²], averaged over the pixel with the sky counted as black. Other threads trace while the caller
+    computes something else.
+    """
     bodies = luminaries(illumination)
     clusters = start_clusters(view.clusters, illumination, bodies)
     sunlight = [(body, _start_sun_cosine(view, body)) for body in bodies]
@@ -318,7 +304,7 @@ def _lit_surface(
     clusters: ClusterLight,
     sunlight: list[tuple[Luminary, Callable[[], Callable[[], np.ndarray]]]],
 ) -> np.ndarray:
-    """`relit_surface_radiance` by the light of its clusters and the begun cosines of sun and moon."""
+    """Radiance ``(n, 3)`` by the light of the clusters and the begun cosines of sun and moon."""
     incident = start_incident_light(view.receivers, clusters)
     cosines = [(body, trace_borders()) for body, trace_borders in sunlight]
     total = incident()

@@ -207,8 +207,11 @@ def disc_directions(luminary: Luminary, count: int) -> np.ndarray:
     return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
-    """Test whether the luminary is visible from the first sample of each receiver.
+def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], np.ndarray]:
+    """Start testing whether the luminary is visible from the first sample of each receiver.
+
+    Other threads trace while the caller computes something else; between kernels that are read one by one they would wait,
+    which takes the processor's time as much as work does.
 
     Parameters
     ----------
@@ -219,17 +222,8 @@ def first_sample_visible(rays: SunRays, luminary: Luminary) -> np.ndarray:
 
     Returns
     -------
-    numpy.ndarray
-        ``(N,)`` bool: the sample faces the luminary, and its point of the disc is not occluded.
-    """
-    return start_first_samples(rays, luminary)()
-
-
-def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], np.ndarray]:
-    """Start `first_sample_visible`, and return the function that gives its result.
-
-    Other threads trace while the caller computes something else; between kernels that are read one by one they would wait,
-    which takes the processor's time as much as work does.
+    Callable
+        Reader of ``(N,)`` bool: the sample faces the luminary, and its point of the disc is not occluded.
     """
     import drjit as dr
     import mitsuba as mi
@@ -245,8 +239,8 @@ def start_first_samples(rays: SunRays, luminary: Luminary) -> Callable[[], np.nd
     return lambda: np.concatenate([np.empty(0, bool), *(np.array(part) for part in parts)])
 
 
-def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.ndarray:
-    """Sum the cosine of incidence over those samples of receivers that face the luminary, without shadow rays.
+def start_sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> Callable[[], np.ndarray]:
+    """Start summing the cosine of incidence over those samples of receivers that face the luminary, without shadow rays.
 
     Parameters
     ----------
@@ -255,14 +249,10 @@ def sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> np.nd
 
     Returns
     -------
-    numpy.ndarray
-        ``(K,)`` float32 weighted sums of the cosine: `sum_incidence` where nothing occludes the luminary.
+    Callable
+        Reader of ``(K,)`` float32 weighted sums of the cosine: `sum_incidence` where nothing occludes the luminary; see
+        `start_first_samples`.
     """
-    return start_sum_facing(rays, luminary, receiver)()
-
-
-def start_sum_facing(rays: SunRays, luminary: Luminary, receiver: np.ndarray) -> Callable[[], np.ndarray]:
-    """Start `sum_facing`, and return the function that gives its result; see `start_first_samples`."""
     read = _start_sums(rays, luminary, receiver, traced=False)
     return lambda: read()[0]
 
@@ -303,7 +293,7 @@ def start_sum_incidence(
 
 
 def _start_sums(rays: SunRays, luminary: Luminary, receiver: np.ndarray, *, traced: bool) -> Callable[[], np.ndarray]:
-    """Reader of what `sum_incidence` returns, ``(2, K)``; without shadow rays of what `sum_facing` returns, ``(1, K)``."""
+    """Reader of what `sum_incidence` returns, ``(2, K)``; without shadow rays of `start_sum_facing`, ``(1, K)``."""
     import drjit as dr
     import mitsuba as mi
 

@@ -74,12 +74,13 @@ def illuminations(place: Place, photographs: Sequence[Observation], models: Sequ
     found = []
     for photograph, model in zip(photographs, models, strict=True):
         camera, instant = photograph.camera, (photograph.time, model.model_dump_json())
-        of_cameras = lights.setdefault(instant, {})
-        if camera.position_m.tobytes() not in of_cameras:
+        of_cameras, position = lights.setdefault(instant, {}), camera.position_m.tobytes()
+        if position not in of_cameras:
             other = next(iter(of_cameras.values()), None)
-            light, _ = illumination_for_camera(place, camera, model, photograph.time, of_another_camera=other)
-            of_cameras[camera.position_m.tobytes()] = light
-        found.append(of_cameras[camera.position_m.tobytes()])
+            of_cameras[position], _ = illumination_for_camera(
+                place, camera, model, photograph.time, of_another_camera=other
+            )
+        found.append(of_cameras[position])
     return found
 
 
